@@ -20,6 +20,7 @@ from dpm2_core.geometry.deskew import measured_turn
 
 _CENTER_TOLERANCE = 0.1  # of a sweep: a stamp this close to the middle counts as the middle
 _WHOLE_RATIO = 1.2  # a sweep is partial if another one is this many times as long
+_MORE_POINTS = 2.0  # or, if the points have no times, has this many times as many points
 # Times are wrong if _MIN_CONTRADICTED of _N_RECENT clouds contradict them; raw ones hardly ever do.
 _N_RECENT, _MIN_CONTRADICTED = 50, 5
 _WRONG_TIMES = (
@@ -32,13 +33,13 @@ class Sweep:
     """The sweep of the last cloud with times. It differs between clouds: a driver's first cloud is a partial sweep.
 
     Attributes:
-        middle: s after the stamp. span: s from the first to the last point; 0: not known.
+        middle: s after the stamp. span: s from the first to the last point; 0: not known. points: their number.
         problem: why the times of the points are not used, in words; empty if they are used.
     """
 
     def __init__(self) -> None:
         self.middle = self.span = 0.0
-        self.problem = ""
+        self.points, self.problem = 0, ""
         self._contradicted = deque[bool](maxlen=_N_RECENT)
 
     def judge(self, contradicted: bool) -> None:
@@ -49,6 +50,7 @@ class Sweep:
 
     def look(self, frame: Frame) -> float:
         """Time from the frame's stamp to the middle of its sweep, s."""
+        self.points = len(frame.points)
         if frame.time_offset is not None and len(frame.time_offset):
             start, end = frame.time_range
             middle, self.span = (start + end) / 2, end - start
@@ -62,9 +64,10 @@ class Sweep:
             frame = replace(frame, time_offset=None)
         return frame.later(self.look(frame))
 
-    def is_part(self, span: float) -> bool:
-        """Whether another sweep, of `span` s, was only a part of a sweep like this one."""
-        return self.span > _WHOLE_RATIO * span
+    def shows_part(self, other: Sweep) -> bool:
+        """Whether the `other` sweep, if it has points, was only a part of a sweep like this one."""
+        is_short = self.span > _WHOLE_RATIO * other.span or self.points > _MORE_POINTS * other.points
+        return other.points > 0 and is_short
 
     def to_stamp(self, frame: Frame, motion: Array | None) -> Array:
         """T_scan_lidar (4, 4): pose of the LiDAR at the stamp relative to its pose in the middle of the sweep.

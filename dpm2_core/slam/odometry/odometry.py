@@ -80,8 +80,8 @@ class Odometry:
         self._motion = MotionState(self._settings)
         self._clock, self._sweep, self._failures = StreamClock(), Sweep(), 0
         self._repeated, self._part, self._images = RepeatedCloud(), RepeatedPart(), RepeatedImages()
-        self._first: Frame | None = None  # kept until the second scan is registered
-        self._first_sweep = Sweep()
+        self._first_sweep = Sweep()  # of the first scan, until the second is registered; then without points
+        self._first: Frame | None = None  # the same for the frame, if its points have times
         self._bridge: Bridge | None = None
         self._breaks: list[tuple[int, bool]] = []  # id of the first keyframe after each; whether loops may cross it
         self._registration = self._tools.registration.fresh()
@@ -96,7 +96,7 @@ class Odometry:
         """Continue with other tools after a registered frame: same pose and motion, and a map of that scan only."""
         self._use_tools(tools)
         self._motion.settings = self._settings
-        self._failures, self._first, self._bridge = 0, None, None
+        self._failures, self._first, self._first_sweep, self._bridge = 0, None, Sweep(), None
         self._registration = tools.registration.fresh()
         scan = self._registration.prepare(self._sweep.centered(frame), self._motion.known_twist)
         self._registration.update(scan, self._motion.T)
@@ -123,7 +123,7 @@ class Odometry:
         received = self._part.new(frame)
         is_part, frame = received is not frame, self._sweep.centered(received)
         dt = self._clock.advance(frame.stamp)
-        if self._first is not None and self._sweep.is_part(self._first_sweep.span):
+        if self._sweep.shows_part(self._first_sweep):
             self._discard_first(frame, dt)
         frame, twist = self._use_priors(frame, motion.seconds + dt)
         scan = self._registration.prepare(frame, twist)
@@ -140,8 +140,8 @@ class Odometry:
         if registration.ok:
             self._sweep.judge(match.contradicted)
             self._repeated.keep(motion.T, self._part.same)
-        if registration.method == "first" and registration.ok and frame.time_offset is not None:
-            self._first, self._first_sweep = frame, copy(self._sweep)
+            self._first_sweep = copy(self._sweep) if registration.method == "first" else Sweep()
+            self._first = frame if self._first_sweep.points and frame.time_offset is not None else None
         T = motion.T
         if self._bridge is not None and registration.ok:
             registration = self._cross_pause(self._bridge, scan, registration)
@@ -209,7 +209,7 @@ class Odometry:
 
     def _discard_first(self, frame: Frame, dt: float) -> None:
         """The first scan shows only a part of the scene, as drivers start in mid-sweep: this frame is the first."""
-        self._first, self._motion.settings = None, self._settings
+        self._first, self._first_sweep, self._motion.settings = None, Sweep(), self._settings
         self._registration = self._tools.registration.fresh()
         self._keyframes.add_uncertainty(self._motion.unknown(dt))
         self._keyframes.request()
@@ -243,7 +243,7 @@ class Odometry:
             self._bridge = Bridge(self._registration, motion, self._clock.now - motion.seconds - dt)
         self._bridge.went_back |= self._clock.went_back
         self._clock.went_back = False
-        self._registration, self._first = self._registration.fresh(), None
+        self._registration, self._first, self._first_sweep = self._registration.fresh(), None, Sweep()
         T_other = None if step is None else motion.T_registered @ step.T
         motion.begin(self._bridge.begin(self._clock.now, T_other, imu, reckoned, stepped))
         return motion.T

@@ -4,6 +4,7 @@ known."""
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -42,10 +43,19 @@ def test_each_cloud_has_a_middle_of_its_own() -> None:
     assert sweep.centered(replace(whole, points=whole.points[late], time_offset=whole.time_offset[late])).stamp == (
         pytest.approx(10**9 + 40_000_000, abs=10)  # ns: times are float32
     )
-    span = sweep.span
+    part = copy(sweep)
     assert sweep.centered(whole).stamp == pytest.approx(10**9, abs=10)
-    assert sweep.is_part(span)
-    assert not sweep.is_part(sweep.span)
+    assert sweep.shows_part(part)
+    assert not sweep.shows_part(sweep)
+
+
+@pytest.mark.parametrize(("before", "is_part"), [(0, False), (4, True), (6, False), (11, False), (30, False)])
+def test_without_times_a_part_of_a_sweep_has_less_than_half_of_the_points(before: int, is_part: bool) -> None:
+    """An empty cloud is not a part: it shows nothing that could be wrong."""
+    other, sweep = Sweep(), Sweep()
+    other.look(Frame(0, np.ones((before, 4), np.float32)))
+    sweep.look(Frame(10**8, np.ones((11, 4), np.float32)))
+    assert sweep.shows_part(other) == is_part
 
 
 def test_a_stamp_near_the_middle_is_left() -> None:
