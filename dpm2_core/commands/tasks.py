@@ -104,13 +104,13 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
     (src, sequences), val = sets
     scans = open_scans(src, kind.learns_from(settings), sequences)
     data = {"task": name, "SRC": str(src.resolve()), "sequences": list(sequences), "scans": len(scans)}
-    data["content"] = scans.digest()
+    data["content of SRC"] = content = scans.digest()
     begin_or_resume(out, resume, settings, data=data)
     validation_scans = None
     if val is not None:
         validation_scans = open_scans(val[0], kind.needs, val[1])
         places = sequence_places(*val)
-        is_same_data = validation_scans.digest() == data["content"]  # such as a copy
+        is_same_data = validation_scans.digest() == content  # such as a copy
         note_training_scans(
             f"--val {val[0]}: the task", places, places if is_same_data else sequence_places(src, sequences)
         )

@@ -3,16 +3,38 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from dpm2_core.errors import UsageError
 from dpm2_core.tasks.pairs import ArrayPair, open_pairs
-from dpm2_core.tasks.scan import RequiredData, ScanSequence, TaskScans
+from dpm2_core.tasks.scan import RequiredData, StoredSequence, TaskScans
 from dpm2_core.tasks.semantic_kitti import kitti_runs, sequence_folders
 
 
-def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: Sequence[str] = ()) -> TaskScans:
+class OpenedScans(TaskScans):
+    """Scans in files."""
+
+    def __init__(self, sequences: Sequence[StoredSequence]) -> None:
+        super().__init__(sequences)
+        self._sequences = sequences
+
+    def digest(self) -> str:
+        """Identifier of these scans, 16 characters, from the size and a part of every file.
+
+        Raises:
+            UsageError: a file cannot be read.
+        """
+        digest = hashlib.sha256()
+        for sequence in self._sequences:
+            digest.update(str(len(sequence)).encode())
+            for index in range(len(sequence)):
+                digest.update(sequence.fingerprint(index))
+        return digest.hexdigest()[:16]
+
+
+def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: Sequence[str] = ()) -> OpenedScans:
     """The scans below a folder: a sequence, a data set of sequences/NN, or a folder of such; or pairs as DSLR has them.
 
     A gap in the numbers of the scans ends a sequence: across it the motion is not that of consecutive scans.
@@ -26,14 +48,14 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
     path = Path(path)
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder")
-    found: list[ScanSequence] = [*pairs_of(path, sequences)]
+    found: list[StoredSequence] = [*pairs_of(path, sequences)]
     for folder in folders_of(path, sequences):
         found += kitti_runs(folder, path, needs)
     if sequences:
         _check_found(path, sequences, found)
     if not found:
         raise UsageError(f"{path}: no scans; want sequences/NN/velodyne/NNNNNN.bin in or below it, or DSLR's pairs")
-    return TaskScans(found)
+    return OpenedScans(found)
 
 
 def pairs_of(path: Path, sequences: Sequence[str]) -> list[ArrayPair]:
@@ -76,7 +98,7 @@ def names_of(folder: Path, path: Path) -> list[str]:
     return [name for name in folder.relative_to(path).parts if name != "sequences"] or [folder.resolve().name]
 
 
-def _check_found(path: Path, sequences: Sequence[str], found: Sequence[ScanSequence]) -> None:
+def _check_found(path: Path, sequences: Sequence[str], found: Sequence[StoredSequence]) -> None:
     folders = {name for folder in sequence_folders(path) for name in names_of(folder, path)}
     pairs = {pair.number for pair in found if isinstance(pair, ArrayPair)}
     missing = [name for name in sequences if name not in folders and not (name.isdecimal() and int(name) in pairs)]

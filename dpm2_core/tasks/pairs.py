@@ -35,6 +35,8 @@ SCALE = 120.0
 _FOLDER_PAIRS = (("s", "d"), ("static", "dynamic"), ("static_out_npy", "dynamic_out_npy"))
 _SAMPLED_SCANS = 64
 """Scans of an array that are used for percentiles and azimuths: with all scans, gigabytes would be read."""
+_COMPARED_VALUES = 512
+"""Values of a scan that are compared with those of before."""
 _MIN_EVENNESS = 0.99
 """Least length of the mean of unit vectors that represent the columns' errors: 8 degrees, root mean square."""
 _FILE_NAME = re.compile(r"(.*?)([sd])(\d+)")
@@ -148,6 +150,13 @@ class ArrayPair:
         static_image, static_mask = self._image(self.static, self.static_limits, index)
         points, static = (_cloud(values, known) for values, known in ((image, mask), (static_image, static_mask)))
         return ImageScan(points, None, static, self.name, index, image, static_image, mask, static_mask)
+
+    def fingerprint(self, index: int) -> bytes:
+        """Shape and middle of both arrays of a scan."""
+        rows = [array[index].ravel() for array in (self.dynamic, self.static)]  # views: only the middle is read
+        middle = max(0, (rows[0].size - _COMPARED_VALUES) // 2)
+        parts = [row[middle : middle + _COMPARED_VALUES].tobytes() for row in rows]
+        return str(self.dynamic.shape).encode() + b"".join(parts)
 
     def _image(self, array: np.ndarray, limits: Array | None, index: int) -> tuple[Tensor, Tensor]:
         """Filled image, and the mask of the slots that had points."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, Self
@@ -47,6 +46,13 @@ class ScanSequence(Protocol):
     def __getitem__(self, index: int) -> TaskScan: ...
 
 
+class StoredSequence(ScanSequence, Protocol):
+    """The same, in files."""
+
+    def fingerprint(self, index: int) -> bytes:
+        """Size and a part of the files of a scan, by which changed ones are detected without reading them."""
+
+
 class TaskScans(Dataset[TaskScan]):
     """The scans of many sequences, numbered through.
 
@@ -71,14 +77,3 @@ class TaskScans(Dataset[TaskScan]):
         """
         sequence, i = self._scan_index[index]
         return sequence[i]
-
-    def digest(self) -> str:
-        """Identifier of these scans, 16 characters, from the first scan and the length of each sequence."""
-        digest, first = hashlib.sha256(), 0
-        for length in self.lengths:
-            scan = self[first]
-            for part in (scan.points, scan.labels, scan.static):
-                digest.update(b"none" if part is None else part.numpy().tobytes())
-            digest.update(str(length).encode())
-            first += length
-        return digest.hexdigest()[:16]

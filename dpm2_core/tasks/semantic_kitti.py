@@ -21,6 +21,8 @@ from dpm2_core.tasks.scan import RequiredData, TaskScan
 
 _POINT_BYTES = {"velodyne": 16, "static": 16, "labels": 4}
 """Bytes of a point in a file of that folder."""
+_PART = 4096
+"""Bytes of a file that are compared: one block of a disk."""
 
 
 def sequence_folders(path: Path) -> list[Path]:
@@ -75,6 +77,11 @@ class _KittiRun:
             static = torch.from_numpy(self._points("static", number)[0])
         return TaskScan(torch.from_numpy(points), labels, static, self.name, number)
 
+    def fingerprint(self, index: int) -> bytes:
+        """Size and middle of each file of a scan."""
+        kinds = ["velodyne", *["labels"] * self.has_labels, *["static"] * self.has_static]
+        return b"".join(_size_and_middle(self._path(kind, self.numbers[index])) for kind in kinds)
+
     def _points(self, kind: str, number: int) -> tuple[Points, NDArray[np.bool_]]:
         """(N, 4) with finite coordinates, 0 for an unknown intensity, and which points of the file they are."""
         points = self._values(kind, number, "<f4").reshape(-1, 4)
@@ -109,3 +116,13 @@ class _KittiRun:
     def _values(self, kind: str, number: int, dtype: DTypeLike) -> np.ndarray:
         self._count(kind, number)
         return np.fromfile(self._path(kind, number), dtype)
+
+
+def _size_and_middle(path: Path) -> bytes:
+    try:
+        with path.open("rb", buffering=0) as file:
+            size = os.fstat(file.fileno()).st_size
+            file.seek(max(0, (size - _PART) // 2))
+            return size.to_bytes(8, "little") + file.read(_PART)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None

@@ -141,6 +141,18 @@ def test_pairs_by_number_and_their_poses(tmp_path: Path) -> None:
         assert first.poses is None
 
 
+def test_the_digest_shows_a_change_of_any_scan(tmp_path: Path) -> None:
+    """Here of the last scan of the last pair. Previously only the first scan of a pair counted."""
+    carla64(tmp_path)
+    before = open_scans(tmp_path).digest()
+    for name in ("s8", "d8"):
+        array = np.load(tmp_path / f"{name}.npy")
+        array[-1] *= 0.5
+        np.save(tmp_path / f"{name}.npy", array)
+        assert open_scans(tmp_path).digest() != before
+        before = open_scans(tmp_path).digest()
+
+
 def test_damage_is_named(tmp_path: Path) -> None:
     """A missing twin, twins of different shapes, a pickle, another shape, NaN, and rows that do not exist."""
     carla64(tmp_path / "a")

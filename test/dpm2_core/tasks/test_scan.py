@@ -118,6 +118,23 @@ def test_damaged_files_are_named_at_once(
     assert f"00/{'labels' if 'labels for' in message else kind}/{name[:6]}" in str(rejected.value)
 
 
+def test_the_digest_shows_a_change_of_any_scan(write_drive: Callable[..., Path], tmp_path: Path) -> None:
+    """New labels, a shorter scan, another twin: each in the last scan. A copy in another folder has the same digest.
+    Previously only the first scan of a sequence counted."""
+    drive, copy = write_drive(tmp_path / "a" / "00"), write_drive(tmp_path / "b" / "00")
+    digests = [open_scans(drive).digest()]
+    assert open_scans(copy).digest() == digests[0]
+    labels, scan, twin = (drive / name for name in ("labels/000005.label", "velodyne/000005.bin", "static/000005.bin"))
+    labels.write_bytes(labels.read_bytes().replace(b"\x32\0\0\0", b"\x33\0\0\0"))
+    digests.append(open_scans(drive).digest())
+    labels.write_bytes(labels.read_bytes()[:-4])
+    scan.write_bytes(scan.read_bytes()[:-16])
+    digests.append(open_scans(drive).digest())
+    twin.write_bytes(twin.read_bytes()[::-1])
+    digests.append(open_scans(drive).digest())
+    assert len(set(digests)) == 4
+
+
 def test_a_name_is_that_of_the_outermost_folders_that_have_it(write_drive: Callable[..., Path], tmp_path: Path) -> None:
     """Each drive of `dpm2 train tasks-data` is a data set with a sequence 00. Previously, the name 00 selected all of
     these."""
