@@ -15,13 +15,11 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import update_bn
 
-from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet, DynamicObjectNetSettings, occupancy, voxels
 from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.pretrained import DYNAMIC
 from dpm2_core.tasks.figures import dynamic_objects_png
-from dpm2_core.tasks.ground_task import UNCOUNTED
-from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.scan import UNCOUNTED, TaskScan, TaskScans, classes_of
 from dpm2_core.tasks.task import Task, TaskOptimizer, TaskTraining
 
 MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
@@ -147,13 +145,9 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
     """Finite points (N, 4), which of them can move, and which have a class at all.
 
     Raises:
-        UsageError: the scan has no labels.
+        UsageError: as `classes_of`.
     """
-    if scan.labels is None:
-        raise UsageError(
-            f"{scan.sequence}, scan {scan.number}: no labels; this task needs them to know the moving objects"
-        )
-    points, labels = scan.points.cpu().numpy(), scan.labels.cpu().numpy()
+    points, labels = scan.points.cpu().numpy(), classes_of(scan, "the moving objects").cpu().numpy()
     finite = np.isfinite(points).all(1)
     points = np.where(finite[:, None], points, np.float32(0))
     return points, np.isin(labels, MOVABLE) | (labels >= FIRST_MOVING), finite & ~np.isin(labels, UNCOUNTED)

@@ -13,7 +13,6 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings
-from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.gndnet import (
     GroundNet,
     GroundSettings,
@@ -23,14 +22,12 @@ from dpm2_core.network.perception.gndnet import (
     obstacle_weight,
 )
 from dpm2_core.tasks.figures import ground_png
-from dpm2_core.tasks.scan import RequiredData, TaskScan, TaskScans
+from dpm2_core.tasks.scan import UNCOUNTED, RequiredData, TaskScan, TaskScans, classes_of
 from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskTraining
 from dpm2_core.tasks.training import mean_figures
 
 GROUND = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain: SemanticKITTI's classes of the ground."""
-UNCOUNTED = (0, 1)
-"""Unlabeled, outlier."""
 
 
 class GroundTraining(SlamTaskTraining):
@@ -132,11 +129,9 @@ def ground_of(scan: TaskScan) -> tuple[Tensor, Tensor]:
     """Which points (N,) are of the ground, and which have a class at all (N,).
 
     Raises:
-        UsageError: the scan has no labels.
+        UsageError: as `classes_of`.
     """
-    if scan.labels is None:
-        raise UsageError(f"{scan.sequence}, scan {scan.number}: no labels; this task needs them to know the ground")
-    classes = scan.labels
+    classes = classes_of(scan, "the ground")
     return torch.isin(classes, classes.new_tensor(GROUND)), ~torch.isin(classes, classes.new_tensor(UNCOUNTED))
 
 

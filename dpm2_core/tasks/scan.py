@@ -11,8 +11,16 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from dpm2_core.errors import UsageError
+
 RequiredData = Literal["labels", "static"]
 """Data that a task requires."""
+UNCOUNTED = (0, 1)
+"""Unlabeled, outlier: SemanticKITTI's classes of points that no task counts."""
+_CLASSES = (
+    *UNCOUNTED, 10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 52, 60, 70, 71, 72, 80, 81, 99,
+    *range(252, 260),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +44,25 @@ class TaskScan:
         """The scan on a device."""
         moved: dict[str, Any] = {name: v.to(device) for name, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **moved)
+
+
+def classes_of(scan: TaskScan, purpose: str) -> Tensor:
+    """Classes (N,) of the points.
+
+    Raises:
+        UsageError: the scan has no labels, or some that are not SemanticKITTI's, such as the 0 to 19 that networks are
+            trained on: a 10 is a car here, and a parking lot there. `purpose`: what the task needs them for.
+    """
+    where = f"{scan.sequence}, scan {scan.number}"
+    if scan.labels is None:
+        raise UsageError(f"{where}: no labels; this task needs them to know {purpose}")
+    unknown = ~torch.isin(scan.labels, scan.labels.new_tensor(_CLASSES))
+    if bool(unknown.any()):
+        raise UsageError(
+            f"{where}: a label has class {int(scan.labels[unknown][0])}, which SemanticKITTI does not have; "
+            "want the numbers of its files, such as 40 for a road"
+        )
+    return scan.labels
 
 
 class ScanSequence(Protocol):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.perception.task_weights import read_weights, write_weights
 from dpm2_core.network.weights import load_strictly
-from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.scan import UNCOUNTED, RequiredData, TaskScan, TaskScans
 from dpm2_core.tasks.task import Task, TaskTraining, task_type
 
 
@@ -42,9 +42,11 @@ def train_task(
         until: stop after this epoch, with a checkpoint; the next call continues from there as if without a stop.
 
     Raises:
-        UsageError: no window fits into the scans, or a checkpoint of another training.
+        UsageError: no window fits into the scans, none of them has a label that counts, or a checkpoint of another
+            training.
     """
     settings = task.settings
+    _check_labels(scans, task.learns_from(settings))
     windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.optimiser.seed)
     epoch_steps = max(1, len(windows) // settings.batch)
     step_settings = {**settings.optimiser.model_dump(), "drop_every": settings.optimiser.drop_every * epoch_steps}
@@ -73,6 +75,7 @@ def measure(task: Task, scans: TaskScans) -> dict[str, float]:
     Raises:
         UsageError: there are no scans, or they lack what the task needs.
     """
+    _check_labels(scans, task.needs)
     was_training = task.training
     task.eval()
     try:
@@ -136,6 +139,18 @@ def _batches(
         for step in range(skip, steps):
             yield [scans[i] for i in order[step * size : (step + 1) * size]], epoch
         epoch, skip = epoch + 1, 0
+
+
+def _check_labels(scans: TaskScans, needs: Sequence[RequiredData]) -> None:
+    """Raise UsageError if labels are needed, and those of all scans are of no class."""
+    if "labels" in needs and len(scans) and all(_is_of_no_class(scans[i]) for i in range(len(scans))):
+        raise UsageError(
+            f"{scans[0].sequence}: no point of any scan has a class: all labels are 0, unlabeled, or 1, outlier"
+        )
+
+
+def _is_of_no_class(scan: TaskScan) -> bool:
+    return scan.labels is not None and bool(torch.isin(scan.labels, torch.tensor(UNCOUNTED)).all())
 
 
 def mean_figures(rows: list[dict[str, float]]) -> dict[str, float]:

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.network.pretrained import PRETRAINED_DIR
+
 from ...helpers.command import Done, dpm2, refused, succeeded
 
 SMALL = ["network.cells=32", "network.cell=2", "network.channels=4", "window=3", "every=1", "slam_loss.points=300"]
@@ -89,6 +91,25 @@ def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
     assert "000001.label: 899 labels for 900 points" in refused("train", "gndnet", recording, "--out", out)
     label.unlink()
     assert "000001.label: No such file" in refused("train", "gndnet", recording, "--out", out)
+
+
+@pytest.mark.parametrize(
+    ("road", "wall", "message"),
+    [(9, 13, "00, scan 0: a label has class 9, which SemanticKITTI does not have"), (1, 0, "00: no point of any scan")],
+)
+def test_labels_that_are_numbered_in_another_way_are_named(
+    recording: Path, tmp_path: Path, road: int, wall: int, message: str
+) -> None:
+    """The numbers that networks are trained on, and ground or not. Previously `movers` took the first for cars and
+    bicycles, both trainings ended with weights that had learned nothing, and all figures were nan."""
+    for path in (recording / "sequences" / "00" / "labels").iterdir():
+        np.where(np.fromfile(path, "<u4") == 40, road, wall).astype("<u4").tofile(path)
+    shipped = {"gndnet": PRETRAINED_DIR / "gndnet.safetensors", "movers": PRETRAINED_DIR / "movers.safetensors"}
+    settings = ("--set", "window=2", "--set", "every=1", "--set", "epochs=1", "--set", "batch=1")
+    for name, weights in shipped.items():
+        assert message in refused("eval-task", name, weights, recording)
+        if road == 1:
+            assert message in refused("train", name, recording, "--out", tmp_path / name, *settings)
 
 
 @pytest.mark.slow
