@@ -5,7 +5,7 @@ After "Differentiable SLAM Helps Deep Learning-based LiDAR Perception Tasks" (BM
 """
 
 from dpm2_core.diffslam.schedule import ScheduleSettings, is_due, total_loss
-from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings, trajectory_loss
+from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings, odometry, trajectory_loss
 from dpm2_core.diffslam.windows import ContiguousWindows
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "SlamLoss",
     "SlamLossSettings",
     "is_due",
+    "odometry",
     "total_loss",
     "trajectory_loss",
 ]

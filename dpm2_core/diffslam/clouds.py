@@ -36,8 +36,12 @@ def window(
         raise UsageError(f"{name}: weights of {len(weights)} scans for clouds of {len(clouds)}")
     pairs = []
     for t, cloud in enumerate(clouds):
+        where = f"{name}, scan {t}"
+        for tensor in (cloud, *(() if weights is None else (weights[t],))):
+            if not isinstance(tensor, Tensor):
+                raise UsageError(f"{where}: want tensors of torch, found {type(tensor).__name__}")
         weight = cloud.new_ones(cloud.shape[:1]) if weights is None else weights[t]
-        _check_scan(cloud, weight, f"{name}, scan {t}")
+        _check_scan(cloud, weight, where)
         keep = _kept_indices(cloud.detach(), weight.detach(), count, voxel)
         # A scan without any weight keeps one point, so that it stays in the window, with a (zero) gradient of weights.
         kept = cloud[keep] if len(keep) else cloud[:1].nan_to_num(0.0, 0.0, 0.0)

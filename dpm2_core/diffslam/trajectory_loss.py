@@ -28,6 +28,8 @@ Weights = Sequence[Tensor] | Tensor | None
 ROTATION_WEIGHT = 25.0
 """Weight of a squared angle relative to a squared distance, m2 / rad2: that of its displacement at 5 m."""
 
+_SAME_FIRST_POSE = 1e-2  # m, rad: rounding in float32 of poses kilometers away
+
 
 class SlamLossSettings(Settings):
     """Odometry over a window of scans, and the cost of its errors."""
@@ -73,17 +75,21 @@ def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = R
     """Eq. 3: mean of `squared_errors` over all poses except the first; a scalar, m2.
 
     Args:
-        poses, reference: (T, 4, 4) T_map_scan of the same scans, both relative to their first. The reference has no
-            gradient. rotation_weight: m2 / rad2.
+        poses: (T, 4, 4) T_map_scan of the scans, relative to the first.
+        reference: the same of the same scans, without gradient.
+        rotation_weight: m2 / rad2.
 
     Raises:
-        UsageError: shapes differ, or there is no second pose.
+        UsageError: shapes differ, there is no second pose, or the first poses differ.
     """
     if poses.shape != reference.shape or poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2:
         raise UsageError(
             f"trajectory loss: poses {tuple(poses.shape)} against {tuple(reference.shape)}; want (T, 4, 4)"
         )
-    return squared_errors(poses[1:].double(), reference[1:].detach().double(), rotation_weight).mean()
+    poses, reference = poses.double(), reference.detach().double()
+    if bool((poses[0].detach() - reference[0]).abs().max() > _SAME_FIRST_POSE):
+        raise UsageError("trajectory loss: the first poses differ; want both trajectories relative to their first pose")
+    return squared_errors(poses[1:], reference[1:], rotation_weight).mean()
 
 
 def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = None,

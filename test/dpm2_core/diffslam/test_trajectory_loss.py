@@ -9,10 +9,9 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from dpm2_core.diffslam import SlamLoss, SlamLossSettings, trajectory_loss
+from dpm2_core.diffslam import SlamLoss, SlamLossSettings, odometry, trajectory_loss
 from dpm2_core.diffslam.icp import IcpSettings
 from dpm2_core.diffslam.soft_lm import SoftLmSettings
-from dpm2_core.diffslam.trajectory_loss import odometry
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 
@@ -273,6 +272,18 @@ def test_trajectory_loss_by_hand() -> None:
         trajectory_loss(poses, poses[:2])
     with pytest.raises(UsageError, match="trajectory loss"):
         trajectory_loss(poses[:1], poses[:1])
+    elsewhere = torch.from_numpy(se3.exp(np.array([0, 0, 1, 100, 0, 0]))) @ poses
+    with pytest.raises(UsageError, match="the first poses differ"):  # as poses of a drive that are not made relative
+        trajectory_loss(poses, elsewhere)
+    assert float(trajectory_loss(elsewhere, elsewhere).detach()) < 1e-12
+
+
+def test_clouds_that_are_no_tensors_are_named(scans: list[Tensor]) -> None:
+    """Arrays, as a frame has them. Previously an AttributeError of numpy."""
+    with pytest.raises(UsageError, match="predicted clouds, scan 0: want tensors of torch, found ndarray"):
+        SlamLoss()([scan.numpy() for scan in scans], scans)  # type: ignore[misc]
+    with pytest.raises(UsageError, match="scans, scan 0: want tensors of torch, found ndarray"):
+        odometry(scans, [np.ones(len(scan)) for scan in scans])  # type: ignore[misc]
 
 
 def test_a_placebo_compares_with_the_window_before(scans: list[Tensor]) -> None:
