@@ -5,7 +5,8 @@ The names below are the public API; `examples/` shows how they are used. Each is
 `import dpm2_core` is quick, and geometric odometry imports neither torch nor matplotlib.
 
 * Data: `open_source(path)` opens a recording of any known format as a `Source` of `Frame`s, each with its `Image`s and
-  their `Camera`s. `write_kitti` and `write_tum` write trajectories.
+  their `Camera`s, the samples of an IMU (`Inertial`), a GNSS `Fix`, and the pose by another odometry (`Guess`), if
+  there are any. `write_kitti` and `write_tum` write trajectories.
 * Settings: `Config` has the settings of `dpm2 run`, `SlamSettings` those of the SLAM, `InputSettings` those of a
   recording. `load_settings(Config, file, ["slam.threads=4"])` reads them from YAML, `dump_settings` writes them.
 * SLAM: `make_slam(settings)` creates a `Slam`, whose `process(frame)` returns a `SlamResult`: the `OdometryResult` with
@@ -48,8 +49,11 @@ if TYPE_CHECKING:  # `as` exports the names
     from dpm2_core.evaluation.figures import trajectory_png as trajectory_png
     from dpm2_core.evaluation.matches import matches_png as matches_png
     from dpm2_core.frame import Camera as Camera
+    from dpm2_core.frame import Fix as Fix
     from dpm2_core.frame import Frame as Frame
+    from dpm2_core.frame import Guess as Guess
     from dpm2_core.frame import Image as Image
+    from dpm2_core.frame import Inertial as Inertial
     from dpm2_core.network.pretrained import load_network as load_network
     from dpm2_core.pipeline import OfflineRun as OfflineRun
     from dpm2_core.slam.build import make_odometry as make_odometry
@@ -73,7 +77,7 @@ _MODULES = {
     "estimates": "Edge Keyframe OdometryResult Registration State",
     "evaluation.figures": "trajectory_png",
     "evaluation.matches": "matches_png",
-    "frame": "Camera Frame Image",
+    "frame": "Camera Fix Frame Guess Image Inertial",
     "network.pretrained": "load_network",
     "pipeline": "OfflineRun",
     "slam.build": "make_odometry make_slam",

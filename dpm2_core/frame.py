@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 Up = tuple[float, float, float]
+_LONGEST_SWEEP = 10.0  # s: times in ms span at least 20
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
 R_AHEAD: Array = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """(3, 3) R_lidar_cam of a camera that looks along the LiDAR's x axis; the camera's axes: x right, y down, z ahead."""
@@ -236,6 +237,9 @@ class Frame:
             raise ValueError(f"frame {self.index}: {len(self.time_offset)} time offsets for {len(self.points)} points")
         if self.time_offset is not None and not np.isfinite(self.time_offset).all():
             raise ValueError(f"frame {self.index}: some time offsets are not finite")
+        first, last = self.time_range
+        if last - first > _LONGEST_SWEEP:
+            raise ValueError(f"frame {self.index}: its time offsets span {last - first:.3g}, want seconds of one sweep")
         if not isinstance(self.stamp, int | np.integer):
             raise ValueError(f"frame {self.index}: its stamp is {self.stamp!r}, want ns, an integer")
         if not isinstance(self.index, int | np.integer):

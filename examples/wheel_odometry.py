@@ -14,8 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core import SlamSettings, make_odometry, open_source
-from dpm2_core.frame import Guess
+from dpm2_core import Guess, SlamSettings, make_odometry, open_source
 from dpm2_core.geometry import se3
 
 

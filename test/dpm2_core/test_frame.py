@@ -100,6 +100,8 @@ def test_every_point_wants_its_time_offset() -> None:
     assert Frame(stamp=0, points=points, time_offset=np.zeros(5, np.float32)).time_offset is not None
     with pytest.raises(ValueError, match="4 time offsets for 5 points"):
         Frame(stamp=0, points=points, time_offset=np.zeros(4, np.float32))
+    with pytest.raises(ValueError, match="frame 7: its time offsets span 100, want seconds"):  # in ms; once accepted
+        Frame(stamp=0, points=points, time_offset=np.linspace(0, 100, 5, dtype=np.float32), index=7)
 
 
 def test_nouns_cannot_be_changed() -> None:
