@@ -29,8 +29,12 @@ _TIMM_NAME = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; it
 
 
 def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
-    """Write all parameters with the network's settings, which replace those in `about`; `half` stores fp16, half the
-    size."""
+    """Write all parameters with the network's settings; `half` stores fp16, half the size.
+
+    Args:
+        about: metadata. `load_network` reads two of them: without `images` "true" the camera is not used, and without
+            `phase` "2" the overlap head counts as untrained.
+    """
     metadata = {**about, "preset": model.settings.preset, "network": model.settings.model_dump_json()}
     write_tensors(model.state_dict(), path, metadata, half)
 
