@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array, Frame, is_rigid
 
 Span = tuple[int, int | None]
 """Position of the first frame, and of the one after the last; None: to the end."""
+_MAX_DEVIATION = 1e-2  # of a rotation from orthonormality: the numbers of some data sets have three digits
 
 
 class Source(Protocol):
@@ -77,6 +78,24 @@ class IndexedSource(ABC):
         """Add a note with the number of frames that have no pose; `known` (len,): which frames have one."""
         if not known.all():
             self.notes.append(f"{where}: {(~known).sum()} of {len(self)} frames have no pose")
+
+
+def true_poses(source: Source) -> Array | None:
+    """`Source.poses`, checked before they are used: a source may be a user's own.
+
+    Raises:
+        UsageError: not one for each frame, or one that is known is no rigid transform.
+    """
+    poses = source.poses
+    if poses is None:
+        return None
+    if np.shape(poses) != (len(source), 4, 4):
+        raise UsageError(f"{source.name}: poses of shape {np.shape(poses)}, want ({len(source)}, 4, 4)")
+    poses = np.asarray(poses, np.float64)
+    for position in np.flatnonzero(np.isfinite(poses).all((1, 2))):
+        if not is_rigid(poses[position], _MAX_DEVIATION):
+            raise UsageError(f"{source.name}: pose {position} is no rigid transform (is it transposed?)")
+    return poses
 
 
 def frame_at(source: Source, position: int) -> Frame:

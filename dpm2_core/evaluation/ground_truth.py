@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpm2_core.data.source import Source, frame_at
+from dpm2_core.data.source import Source, frame_at, true_poses
 from dpm2_core.data.trajectory import Trajectory, read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
@@ -22,10 +22,11 @@ def read_ground_truth(source: Source, path: Path | str | None, start: int, stop:
         path: file of poses (KITTI: left camera; TUM: LiDAR); None for those of the source.
 
     Raises:
-        UsageError: no such file, or it is of another drive or of other frames.
+        UsageError: no such file, or it is of another drive or of other frames; or as `true_poses`.
     """
     if path is None:
-        return None if source.poses is None else source.poses[start:stop]
+        poses = true_poses(source)
+        return None if poses is None else poses[start:stop]
     truth = read_trajectory(path)
     if truth.kind != "kitti":
         _check_overlap(truth, path, source, start, stop)

@@ -14,7 +14,7 @@ from pydantic import Field, NonNegativeFloat, field_validator
 from dpm2_core.config import Settings
 from dpm2_core.console import Advance, untold
 from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, packed_writer, write_packed
-from dpm2_core.data.source import Source
+from dpm2_core.data.source import Source, true_poses
 from dpm2_core.data.sweep_parts import whole_sweeps
 from dpm2_core.descriptors import levelling
 from dpm2_core.errors import UsageError
@@ -194,9 +194,10 @@ def pack(
     `frames`: positions to pack; `progress` is called for each. `settings`: what made the poses, see `check_same`.
 
     Raises:
-        UsageError: the source has no poses, or some of its frames lack an image that others have.
+        UsageError: the source has no poses, or wrong ones, or some of its frames lack an image that others have.
     """
-    if source.poses is None:
+    poses = true_poses(source)
+    if poses is None:
         raise UsageError(f"{source.name}: no ground truth poses, which the training needs")
     chosen = frames or range(len(source))
     with packed_writer(folder) as writer:
@@ -204,7 +205,7 @@ def pack(
         twist, scale, first, done = np.zeros(6), 0.0, None, 0
         for position, frame in whole_sweeps(source.frames(chosen.start, chosen.stop), chosen.start):
             progress(position + 1 - chosen.start, len(chosen))
-            pose, done_before = source.poses[position], done
+            pose, done_before = poses[position], done
             done = len(range(chosen.start, position + 1, chosen.step))  # chosen positions, also those of parts
             readable = frame.problem is None and len(frame.points) >= MIN_POINTS
             if done == done_before or not readable or not np.isfinite(pose).all():

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ROOM_SCALE
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture
 from dpm2_core.learning.generate import GenerateSettings, generate, pack
+from dpm2_core.pipeline import OfflineRun
+from dpm2_core.slam.settings import Config, SlamSettings
 
 from ...helpers import rooms
 from ...helpers.command import dpm2
@@ -56,6 +59,28 @@ class Sweeps(IndexedSource):
         images = (make_image(np.random.default_rng(position)),) if self.images or position == 3 else ()
         points = np.c_[seen, np.ones(len(seen))].astype(np.float32)
         return Frame(position * 10**8, points, offsets, images, index=position)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda poses: poses[:5], r"sweeps: poses of shape \(5, 4, 4\), want \(6, 4, 4\)"),
+        (lambda poses: poses[:, :3], r"sweeps: poses of shape \(6, 3, 4\)"),
+        (lambda poses: poses.transpose(0, 2, 1), r"sweeps: pose 1 is no rigid transform \(is it transposed\?\)"),
+    ],
+)
+def test_wrong_poses_of_a_source_are_named_at_once(
+    change: Callable[[Array], Array], message: str, tmp_path: Path
+) -> None:
+    """By pack and by a run. Previously transposed ones were packed and trained on, and the others were an error of
+    NumPy, of a run at its end."""
+    source = Sweeps(np.zeros((100, 3)))
+    source.poses = change(source.poses)
+    with pytest.raises(UsageError, match=message):
+        pack(source, tmp_path / "packed", tiny())
+    with pytest.raises(UsageError, match=message):
+        OfflineRun(source, Config(slam=SlamSettings(registration="geometric")))
+    assert not (tmp_path / "packed").exists()
 
 
 def test_a_room_is_packed_as_the_network_sees_it(tmp_path: Path) -> None:
