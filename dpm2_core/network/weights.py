@@ -168,6 +168,8 @@ def load_model_and_metadata(path: Path) -> tuple[DeepPointMap2, dict[str, str]]:
 
 
 def _network_settings(path: Path, metadata: Mapping[str, str]) -> NetworkSettings:
+    if "task" in metadata:
+        raise UsageError(f"{path}: weights of the task {metadata['task'][:40]!r}, not of the network of the SLAM")
     settings = described(path, metadata, NetworkSettings)
     backbone = settings.image.backbone
     if backbone.startswith("timm:") and not _TIMM_NAME.fullmatch(backbone):

@@ -123,6 +123,11 @@ def test_missing_truncated_and_foreign_files(saved: Path, tmp_path: Path) -> Non
     save_file({"x": torch.zeros(1)}, tmp_path / "foreign.safetensors")
     with pytest.raises(UsageError, match="without a network description"):
         load_model(tmp_path / "foreign.safetensors")
+    save_file(
+        {"head.bias": torch.zeros(1)}, tmp_path / "task.safetensors", {"task": "gndnet", "network": '{"cell": 1}'}
+    )
+    with pytest.raises(UsageError, match="weights of the task 'gndnet', not of the network"):
+        load_model(tmp_path / "task.safetensors")
 
 
 def test_weights_that_fit_in_part(tmp_path: Path) -> None:
