@@ -109,10 +109,12 @@ def evaluate(
         failed_frames: as counted by the SLAM system; by default the frames without an estimate.
 
     Raises:
-        UsageError: the two differ in length, or fewer than two frames have both poses.
+        UsageError: the two differ in length or have another shape, or fewer than two frames have both poses.
     """
     if len(gt) != len(est):
         raise UsageError(f"ground truth has {len(gt)} poses, the estimate {len(est)}")
+    if not np.shape(gt)[1:] == np.shape(est)[1:] == (4, 4):
+        raise UsageError(f"ground truth of shape {np.shape(gt)}, estimate of {np.shape(est)}; want (N, 4, 4)")
     has_gt, has_est = known(gt), known(est)
     both = has_gt & has_est
     if both.sum() < 2:

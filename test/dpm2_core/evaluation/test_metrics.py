@@ -120,6 +120,8 @@ def test_standing_still_has_no_drift_per_length() -> None:
 def test_what_cannot_be_compared_is_rejected() -> None:
     with pytest.raises(UsageError, match="101 poses, the estimate 100"):
         evaluate(_straight(), _straight(100))
+    with pytest.raises(UsageError, match=r"estimate of \(101, 3, 4\); want \(N, 4, 4\)"):  # was an error of NumPy
+        evaluate(_straight(), _straight()[:, :3])
     nothing = np.full((10, 4, 4), np.nan)
     with pytest.raises(UsageError, match="only 0 of 10 frames"):
         evaluate(_straight(10), nothing)
