@@ -206,7 +206,9 @@ class OdometryResult:
     Attributes:
         stamp: ns, of the cloud. index: `Frame.index`.
         T_odom_lidar: (4, 4), always finite; the predicted pose where `registration.ok` is False.
-        covariance: (6, 6) as in `Registration`, of T_odom_lidar relative to the last frame before that was registered.
+        covariance: (6, 6) as in `Registration`, of T_odom_lidar relative to the nearest scan of the local map, which is
+            the frame before or one some meters back; of a predicted pose, relative to the last frame that was
+            registered.
         twist: (6,) [rad/s, m/s] in the LiDAR frame.
         registration: how it was found; `BETWEEN` is not a failure.
         keyframe: set when this frame became one.

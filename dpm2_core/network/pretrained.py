@@ -119,7 +119,8 @@ def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:
 def load_network(weights: str, threads: int) -> DeepPointMap2:
     """The network with weights, ready to run on the CPU; without its camera if it was trained without images.
 
-    The weights are loaded once in a process, see `load_once`.
+    The weights are loaded once in a process, see `load_once`: all callers share the layers, which are frozen. To train
+    from them, use `network.weights.load_weights` or `load_fitting`.
 
     Args:
         weights: name of shipped weights, or path of a .safetensors file.
