@@ -55,11 +55,13 @@ class SweepParts:
             self._has_close_parts |= period < MAX_PERIOD
         elif not self._recognize_parts(frame, period):
             return frame
-        if step <= 0 or (frame.time_offset is None and len(frame.points)):
+        if step <= 0:
             self._stop_joining()
             return frame
-        start, end = frame.time_range
-        if end - start > 2 * SWEEP:  # wrong times: the unit is unknown if few points span little, or one is an outlier
+        received, (start, end) = frame, frame.time_range
+        # No times if all points are of one moment; wrong ones if few points span little, so that the unit is unknown,
+        # or if one is an outlier.
+        if frame.time_offset is None or end - start > 2 * SWEEP:
             start, end, frame = 0.0, 0.0, replace(frame, points=NO_POINTS, time_offset=None)
         if step > SWEEP:  # a sweep or more was dropped in between
             self._parts.clear()
@@ -68,6 +70,9 @@ class SweepParts:
             return None
         sweep = frame if len(self._parts) == 1 else _joined(self._parts, frame)
         self._parts.clear()
+        if len(received.points) and not len(sweep.points):  # no cloud has usable times any more
+            self._stop_joining()
+            return received
         if not self._has_close_parts:  # whole clouds, of which two followed each other too soon once
             self._stop_joining()
         self._has_close_parts = False

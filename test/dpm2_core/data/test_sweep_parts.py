@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dpm2_core.data.messages import decode_points, point_cloud
 from dpm2_core.data.sweep_parts import SweepParts
 from dpm2_core.estimates import BETWEEN, OdometryResult, Registration, State
 from dpm2_core.frame import NO_POINTS, Camera, Frame, Guess, Image, Inertial
@@ -174,6 +175,23 @@ def test_a_part_with_wrong_times_leaves_out_itself_alone() -> None:
     out = joined([wrong if i == 6 else part(i) for i in range(10)])
     assert out[1:9] == [None] * 8
     assert numbers(out[9]) == [0, 1, 2, 3, 4, 5, 7, 8, 9]
+
+
+def test_a_part_with_a_single_return_leaves_out_itself_alone() -> None:
+    """Such a cloud is read without times. In each sweep it discarded the parts before it, and was registered alone: no
+    sweep was complete, and the odometry was lost."""
+    one = point_cloud({name: np.ones(1, np.float32) for name in ("x", "y", "z", "time")}, 0)
+    points, offset = decode_points(one)
+    lone = [replace(part(i), points=points, time_offset=offset) if i % 10 == 5 else part(i) for i in range(40)]
+    sweeps = [sweep for sweep in joined(lone)[1:] if sweep is not None]
+    assert [sweep.index for sweep in sweeps] == [9, 19, 29, 39]
+    assert [number for sweep in sweeps for number in numbers(sweep)] == [i for i in range(40) if i % 10 != 5]
+
+
+def test_clouds_that_no_longer_have_times_are_handed_on_as_they_are() -> None:
+    untimed = [replace(part(i), time_offset=None) for i in range(10, 40)]
+    out = joined([*(part(i) for i in range(10)), *untimed])
+    assert all(sweep is frame for sweep, frame in zip(out[21:], untimed[11:], strict=True))
 
 
 def test_sweeps_without_a_return_are_joined_too() -> None:
