@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import array
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from dpm2_core.data.frames import Calibration
 from dpm2_core.data.projection import painted
 from dpm2_core.estimates import Edge
 from dpm2_core.frame import Array, Frame
@@ -106,16 +107,17 @@ class Projection:
         names = ["dpm2/projection", *["dpm2/second_projection"] * second]
         self._publishers = [node.create_publisher(Image, name, 1) for name in names]
 
-    def show(self, frame: Frame, cameras: Sequence[str], messages: Mapping[str, tuple[int, Any]]) -> None:
-        """Publish each image of a frame; `cameras`: topics of the cameras; `messages`: `beside` of its `Bundle`."""
+    def show(self, frame: Frame, calibration: Calibration) -> None:
+        """Publish each image of a frame."""
+        cameras = {camera.topic: camera for camera in calibration.cameras}
         for image in frame.images:
             topic = image.camera.name
-            publisher = self._publishers[cameras.index(topic)]
+            publisher = self._publishers[list(cameras).index(topic)]
             if not publisher.get_subscription_count():
                 continue
             pixels = painted(image, frame.points)
             height, width = pixels.shape[:2]
-            image_header = header(frame.stamp, messages[topic][1].header.frame_id)
+            image_header = header(frame.stamp, calibration.frame_of(cameras[topic]))
             message = Image(header=image_header, height=height, width=width, encoding="rgb8")
             message.step, message.data = 3 * width, bytes_to_array(pixels.tobytes())
             publisher.publish(message)

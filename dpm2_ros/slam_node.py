@@ -213,7 +213,8 @@ class SlamNode(ManagedNode):
             self._report_unpublished()
             self._begin_drive()
         self._health.add(tracked, time.monotonic() - bundle.arrival)
-        self._projection.show(frame, [camera.topic for camera in self.calibration.cameras], bundle.beside)
+        if self._slam.frame is not None and tracked.registration.method != BETWEEN:
+            self._projection.show(self._slam.frame, self.calibration)
         if (scale := self._slam.odometry.scale) != self._health.scale:
             if scale:  # empty where the drive has just begun again
                 self.get_logger().info(f"slam.preset auto: {scale}, by what the scans show")

@@ -67,6 +67,7 @@ class Slam:
         odometry: processes every frame.
         mapper: the map. It receives every keyframe, unless there is a localizer.
         localizer: localizes every keyframe in the map, which is then not changed; None: the map grows.
+        frame: the last frame that was processed, parts of a sweep joined; None before the first.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class Slam:
         self.odometry, self.mapper, self.localizer = odometry, mapper, localizer
         self._thumbnail_width = thumbnail_width
         self._pictured = pictured
+        self.frame: Frame | None = None
         self._parts = SweepParts()
         self._last: OdometryResult | None = None  # of a whole sweep
         self._T_map_odom: Array | None = None  # of the map that grows, valid until the next keyframe
@@ -118,7 +120,8 @@ class Slam:
         sweep = self._parts.join(frame)
         if sweep is None and self._last is not None:
             return self.odometry.between(self._last, frame)
-        self._last = self._process_sweep(sweep or frame)
+        self.frame = sweep or frame
+        self._last = self._process_sweep(self.frame)
         return self._last
 
     def _process_sweep(self, frame: Frame) -> OdometryResult:

@@ -62,6 +62,21 @@ def test_the_cloud_is_painted_into_its_image_for_who_looks(rig: Callable[..., Ri
     assert stamp_ns(painted[-1].header) == r.drive.stamp(1)
 
 
+def test_of_parts_of_a_sweep_the_whole_sweep_is_painted(rig: Callable[..., Rig]) -> None:
+    """Each part was painted alone, a tenth of the cloud on the same image, ten times as often."""
+    r, camera = with_camera(rig, PLACE, "ros.sync_timeout:=2.0")
+    painted = r.harness.hear(Image, "/dpm2/projection", 100)
+    r.wait(lambda: r.node.count_subscribers("/dpm2/projection"), "the subscription")
+    for n in (0, 1):
+        camera.send(n, offset=0.045)
+        r.send_in_parts(n)
+    r.wait(lambda: len(painted) == 3, "the projections")
+    stamps = [stamp_ns(message.header) - r.drive.start for message in painted]
+    assert stamps == [0, 90_000_000, 190_000_000]  # nothing tells that the first cloud is a part
+    assert [message.header.frame_id for message in painted] == ["camera"] * 3
+    assert np.count_nonzero(painted[-1].data) > np.count_nonzero(painted[0].data)
+
+
 SECOND = "input.second_image_topic:=/rear/image"
 
 
