@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from operator import itemgetter
 
 import numpy as np
 
-from dpm2_core.frame import NO_POINTS, Frame, Image
+from dpm2_core.frame import NO_POINTS, Frame, Guess, Image
+from dpm2_core.geometry import se3
 
 MAX_PART_SPAN = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
@@ -138,8 +138,6 @@ def _joined(parts: Sequence[Frame], last: Frame) -> Frame:
     timed = [part.later((last.stamp - part.stamp) * 1e-9) for part in parts]
     offsets = [part.time_offset for part in timed if part.time_offset is not None]
     starts, ends = zip(*[part.time_range for part in timed], strict=True)
-    middle = (min(starts) + max(ends)) / 2
-    guesses = [(abs(sum(part.time_range) / 2 - middle), part.guess) for part in timed if part.guess is not None]
     points = np.concatenate([part.points for part in parts])
     return replace(
         last,
@@ -147,11 +145,27 @@ def _joined(parts: Sequence[Frame], last: Frame) -> Frame:
         problem=None if len(points) else last.problem,  # an unreadable part is one without points
         time_offset=np.concatenate(offsets) if offsets else None,
         images=_nearest([image for part in timed for image in part.images]),
-        guess=min(guesses, key=itemgetter(0))[1] if guesses else None,  # nearest to the middle of the sweep
+        guess=_guess_at((min(starts) + max(ends)) / 2, timed),
         fix=next((part.fix for part in reversed(parts) if part.fix is not None), None),
         dropped=sum(part.dropped for part in parts),
         stepped=any(part.stepped for part in parts),
     )
+
+
+def _guess_at(middle: float, parts: Sequence[Frame]) -> Guess | None:
+    """The pose of another odometry `middle` s after the stamp: between those of the parts before and after. The nearest
+    one would be half a part off, now to one side, now to the other."""
+    known = [(sum(part.time_range) / 2 - middle, part.guess) for part in parts if part.guess is not None]
+    nearest = min(known, key=lambda one: abs(one[0]), default=None)
+    if nearest is None:
+        return None
+    at, guess = nearest
+    others = [one for one in known if one[0] * at < 0]  # beyond the middle
+    if not others:
+        return guess
+    beyond, other = min(others, key=lambda one: abs(one[0]))
+    T = se3.interpolated(guess.T_other_lidar, other.T_other_lidar, at / (at - beyond))
+    return replace(guess, T_other_lidar=T)
 
 
 def _nearest(images: Sequence[Image]) -> tuple[Image, ...]:
