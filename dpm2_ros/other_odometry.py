@@ -77,8 +77,11 @@ class OtherOdometry:
         began = time.monotonic()
         with self._changed:
             end = began + (WAIT if self._consecutive_missed < PATIENCE else 0.0)
-            while (found := self._try_find(stamp, base)) is None and (remaining := end - time.monotonic()) > 0:
+            found, problem = self._try_find(stamp, base)
+            while found is None and (remaining := end - time.monotonic()) > 0:
                 self._changed.wait(remaining)
+                found, problem = self._try_find(stamp, base)
+            self.problem = problem  # only now: the executor's thread reads it while this one waits
             self._consecutive_missed = 0 if found is not None else self._consecutive_missed + 1
             self._last_missed = None if found is not None else (stamp, base, began + WAIT)
         self.found, self.missed = self.found + (found is not None), self.missed + (found is None)
@@ -134,16 +137,13 @@ class OtherOdometry:
             problems.append(f"its distances are {abs(self.slip):.1%} too {'long' if self.slip > 0 else 'short'}")
         return "; ".join(problems)
 
-    def _try_find(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
-        """As `_find`; sets `problem`."""
+    def _try_find(self, stamp: int, base: str) -> tuple[tuple[Array, Array | None] | None, str]:
+        """As `_find`, and the `problem` that is to be set then."""
         try:
             found = self._find(stamp, base)
         except UsageError as error:
-            self.problem = f"{self.source}: {error}"
-            return None
-        if found is not None:
-            self.problem = ""
-        return found
+            return None, f"{self.source}: {error}"
+        return found, self.problem if found is None else ""
 
     def _find(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
         static, source = self._static(), base if self._subscription is None else self._child

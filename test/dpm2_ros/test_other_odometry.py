@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,13 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2, PointField
 
 from dpm2_core.data.messages import cloud_fields, stamp_ns
-from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import edge_to_msg, header, transform_to_msg
+from dpm2_ros.other_odometry import WAIT, OtherOdometry
+from dpm2_ros.settings import RosSettings
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf_message import TFMessage
 from test.helpers.rig import ACCURATE, Rig, publish_static
@@ -232,6 +235,22 @@ def test_parts_of_a_sweep_do_not_clear_what_the_last_sweep_has_shown(robot: Call
     r.turn_wheels(5)
     r.lidar.publish(r.parts(4)[0])
     assert saying("left out: its own covariance")(r.status("other odometry", having(**{"clouds with it": 41})))
+
+
+def test_while_a_cloud_waits_for_it_nothing_is_wrong(robot: Callable[..., Robot], drive: Any) -> None:
+    """Parts of a sweep wait for its next message nearly all the time: /diagnostics often said that it ends before the
+    cloud, and that dpm2 goes on without, although each cloud had it."""
+    r = robot("tf")
+    other = OtherOdometry(r.node, RosSettings(odom_source="tf"), TransformTree)
+    r.turn_wheels(0)
+    with ThreadPoolExecutor(1) as worker:
+        r.wait(lambda: other.T_odom_base(drive.stamp(0), "base_link") is not None, "the wheels")
+        assert other.guess(drive.stamp(0), "base_link", np.eye(4)) is not None
+        later = worker.submit(other.guess, drive.stamp(1), "base_link", np.eye(4))
+        time.sleep(WAIT / 2)
+        assert other.problem == ""
+        assert later.result() is None
+    assert other.problem == "/tf: odom -> base_link ends 0.10 s before the cloud"
 
 
 def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], drive: Any) -> None:
