@@ -18,6 +18,7 @@ from dpm2_ros.settings import RosSettings
 
 _IMAGES = (Image, CompressedImage)
 _IMU_DEPTH = 1000  # samples that may wait: those of one second
+_PARTS = 10  # clouds that may wait for each of `ros.queue_depth` sweeps: its parts
 
 
 class MatchedSubscription:
@@ -35,7 +36,8 @@ class MatchedSubscription:
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
         self._node, self._requested_kind, self._callback = node, kind, callback
-        self._reliability_setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
+        depths = {Imu: _IMU_DEPTH, PointCloud2: _PARTS * ros.queue_depth}
+        self._reliability_setting, self._depth = ros.reliability, depths.get(kind, ros.queue_depth)
         self._unresolved_topic, self.topic = topic, node.resolve_topic_name(topic)
         self._current = ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, kind
         self._subscription: Any = None

@@ -150,6 +150,22 @@ def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
     assert "/a" not in {s.topic_name for s in n.subscriptions}
 
 
+def test_parts_of_a_sweep_wait_for_a_busy_node_as_long_as_sweeps(node: Callable[..., Node]) -> None:
+    """At 100 Hz, a part was lost on the way whenever the executor was busy for a tenth of a second."""
+    listener = node()
+    publisher = listener.create_publisher(PointCloud2, "/points", 100)
+    made = inputs(listener, points_topic="/points")
+    end = time.monotonic() + 10
+    while not publisher.get_subscription_count() and time.monotonic() < end:
+        time.sleep(0.01)
+    for n in range(1, 61):
+        publisher.publish(cloud_to_msg(CLOUD, n * 10_000_000, "lidar"))
+    time.sleep(0.3)  # until all have arrived
+    while made.synchronizer.received + made.losses.count < 60 and time.monotonic() < end:
+        rclpy.spin_once(listener, timeout_sec=0.1)
+    assert (made.synchronizer.received, made.losses.count) == (60, 0)
+
+
 def test_a_camera_info_that_was_sent_once_arrives(node: Callable[..., Node]) -> None:
     """A latched CameraInfo that was sent long before the subscription is received."""
     n = node()
