@@ -38,6 +38,7 @@ class SweepParts:
         self._parts: list[Frame] = []
         self._joining = False  # whether clouds have been recognized as parts
         self._has_close_parts = False  # whether a part of this sweep followed another one as soon as parts do
+        self._has_joined = False  # whether the last sweep had such parts
 
     def join(self, frame: Frame) -> Frame | None:
         """The sweep that this frame completes, with its stamp and index; the frame itself unless it is a part; None
@@ -49,8 +50,8 @@ class SweepParts:
         """
         step = float("inf") if self._stamp is None else (frame.stamp - self._stamp) * 1e-9
         self._stamp, period = frame.stamp, step / (1 + frame.dropped)
-        if period > SWEEP:  # a pause, or whole clouds
-            self._stop_joining()
+        if period > SWEEP:
+            self._resume(frame)
         if self._joining:
             self._has_close_parts |= period < MAX_PERIOD
         elif not self._recognize_parts(frame, period):
@@ -73,10 +74,22 @@ class SweepParts:
         if len(received.points) and not len(sweep.points):  # no cloud has usable times any more
             self._stop_joining()
             return received
+        self._has_joined = self._has_close_parts
         if not self._has_close_parts:  # whole clouds, of which two followed each other too soon once
             self._stop_joining()
         self._has_close_parts = False
         return sweep
+
+    def _resume(self, frame: Frame) -> None:
+        """A frame after more than a sweep: after a pause, parts go on as parts; one that is not followed soon does not.
+
+        Alone, the first part after a pause would be registered as if it were a sweep, and become a keyframe.
+        """
+        is_alone = len(self._parts) > 0 and not self._has_close_parts
+        if not self._has_joined or is_alone or not may_be_part(frame):
+            self._stop_joining()
+        self._parts.clear()
+        self._has_close_parts = False
 
     def _recognize_parts(self, frame: Frame, period: float) -> bool:
         """Whether this frame and the previous one, `period` s earlier, are the first two parts of a drive."""
@@ -95,7 +108,7 @@ class SweepParts:
     def _stop_joining(self) -> None:
         """Join no more clouds until parts are recognized again."""
         self._parts.clear()
-        self._joining, self._has_close_parts = False, False
+        self._joining, self._has_close_parts, self._has_joined = False, False, False
 
     def _span_to(self, end: float) -> float:
         """s from the first point of the parts to the last, which was measured `end` s after the last stamp."""

@@ -201,6 +201,23 @@ def test_sweeps_without_a_return_are_joined_too() -> None:
     assert all(sweep is None or len(numbers(sweep)) > 7 for sweep in out[43:])
 
 
+def test_the_first_part_after_a_pause_waits_for_its_sweep() -> None:
+    """It was handed on alone, a tenth of the scene, was registered as a sweep, and became a keyframe."""
+    kept = [*range(23), *range(35, 55)]  # 12 parts are lost
+    found = dict(zip(kept, joined([part(i) for i in kept]), strict=True))
+    assert {i: numbers(sweep) for i, sweep in found.items() if sweep is not None and i} == {
+        end: list(range(end - 9, end + 1)) for end in (9, 19, 44, 54)
+    }
+
+
+def test_short_clouds_that_come_no_sooner_than_sweeps_are_whole_ones_again() -> None:
+    """As of another driver on the topic: only the first of them waits, for a part that follows it."""
+    later = [part(100 + 12 * i) for i in range(4)]
+    first, *rest = joined([*(part(i) for i in range(20)), *later])[20:]
+    assert first is None
+    assert rest == later[1:]
+
+
 @pytest.mark.parametrize("kept", [range(10), (0, 1, 2, 3, 5, 6, 9), (0, 1, 2, 4, 6, 9)])
 def test_the_pose_of_another_odometry_is_that_at_the_middle_of_the_sweep(kept: Sequence[int]) -> None:
     """Parts are lost, and part 5 has no pose. The pose of the nearest part was used: of ten parts one of the two middle
