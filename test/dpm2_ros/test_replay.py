@@ -69,8 +69,8 @@ def test_started_at_the_same_moment_nothing_is_lost(
 
 
 def test_losses_are_in_diagnostics(rig: Callable[..., Rig], drive: Any) -> None:
-    """Losses are counted: while the executor is blocked, DDS keeps no more clouds than the queue depth."""
-    r = rig("ros.queue_depth:=2")
+    """Losses are counted: while the executor is blocked, DDS keeps no more clouds than ten times the queue depth."""
+    r = rig("ros.queue_depth:=1")
     r.send_and_wait(0)
     holding, going_on = threading.Event(), threading.Event()
     r.harness.node.create_timer(0.05, lambda: holding.is_set() or (holding.set(), going_on.wait(120)))
