@@ -235,9 +235,9 @@ class Frame:
             raise ValueError(f"frame {self.index}: points are {found}, want (N, 4) float32")
         if self.time_offset is not None and self.time_offset.shape != self.points.shape[:1]:
             raise ValueError(f"frame {self.index}: {len(self.time_offset)} time offsets for {len(self.points)} points")
-        if self.time_offset is not None and not np.isfinite(self.time_offset).all():
-            raise ValueError(f"frame {self.index}: some time offsets are not finite")
         first, last = self.time_range
+        if not np.isfinite([first, last]).all():  # so is any other that is not finite
+            raise ValueError(f"frame {self.index}: some time offsets are not finite")
         if last - first > _LONGEST_SWEEP:
             raise ValueError(f"frame {self.index}: its time offsets span {last - first:.3g}, want seconds of one sweep")
         if not isinstance(self.stamp, int | np.integer):

@@ -109,15 +109,14 @@ class Projection:
 
     def show(self, frame: Frame, calibration: Calibration) -> None:
         """Publish each image of a frame."""
-        cameras = {camera.topic: camera for camera in calibration.cameras}
-        for image in frame.images:
-            topic = image.camera.name
-            publisher = self._publishers[list(cameras).index(topic)]
-            if not publisher.get_subscription_count():
+        images = {image.camera.name: image for image in frame.images}
+        for publisher, camera in zip(self._publishers, calibration.cameras, strict=False):
+            image = images.get(camera.topic)
+            if image is None or not publisher.get_subscription_count():
                 continue
             pixels = painted(image, frame.points)
             height, width = pixels.shape[:2]
-            image_header = header(frame.stamp, calibration.frame_of(cameras[topic]))
+            image_header = header(frame.stamp, calibration.frame_of(camera))
             message = Image(header=image_header, height=height, width=width, encoding="rgb8")
             message.step, message.data = 3 * width, bytes_to_array(pixels.tobytes())
             publisher.publish(message)

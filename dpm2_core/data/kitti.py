@@ -22,6 +22,7 @@ from dpm2_core.data.cloud_folder import name_times
 from dpm2_core.data.imu import KEPT
 from dpm2_core.data.scan_file import KITTI, chosen, drives_below
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import ROUNDED
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.time_order import out_of_order
 from dpm2_core.data.velodyne import VelodyneDrive
@@ -29,9 +30,6 @@ from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
 from dpm2_core.geometry import se3
-
-ROUNDED = 0.01
-"""Tolerance for a rotation in a calibration file, whose numbers are rounded."""
 
 
 class KittiSource(VelodyneDrive):

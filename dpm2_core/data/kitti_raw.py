@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpm2_core.data.kitti import ROUNDED, left_color_camera
+from dpm2_core.data.kitti import left_color_camera
 from dpm2_core.data.scan_file import KITTI_RAW, chosen
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import ROUNDED
 from dpm2_core.data.text import read_keyed, read_numbers, required
 from dpm2_core.data.velodyne import VelodyneDrive
 from dpm2_core.errors import UsageError

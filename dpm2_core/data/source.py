@@ -16,7 +16,8 @@ from dpm2_core.frame import Array, Frame, is_rigid
 
 Span = tuple[int, int | None]
 """Position of the first frame, and of the one after the last; None: to the end."""
-_MAX_DEVIATION = 1e-2  # of a rotation from orthonormality: the numbers of some data sets have three digits
+ROUNDED = 0.01
+"""Deviation of a rotation from an orthonormal one that is rounding: some files have three decimals."""
 
 
 class Source(Protocol):
@@ -93,7 +94,7 @@ def true_poses(source: Source) -> Array | None:
         raise UsageError(f"{source.name}: poses of shape {np.shape(poses)}, want ({len(source)}, 4, 4)")
     poses = np.asarray(poses, np.float64)
     for position in np.flatnonzero(np.isfinite(poses).all((1, 2))):
-        if not is_rigid(poses[position], _MAX_DEVIATION):
+        if not is_rigid(poses[position], ROUNDED):
             raise UsageError(f"{source.name}: pose {position} is no rigid transform (is it transposed?)")
     return poses
 

@@ -88,7 +88,6 @@ class SweepParts:
         is_alone = len(self._parts) > 0 and not self._has_close_parts
         if not self._has_joined or is_alone or not may_be_part(frame):
             self._stop_joining()
-        self._parts.clear()
         self._has_close_parts = False
 
     def _recognize_parts(self, frame: Frame, period: float) -> bool:

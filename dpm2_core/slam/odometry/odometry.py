@@ -80,24 +80,27 @@ class Odometry:
         self._motion = MotionState(self._settings)
         self._clock, self._sweep, self._failures = StreamClock(), Sweep(), 0
         self._repeated, self._part, self._images = RepeatedCloud(), RepeatedPart(), RepeatedImages()
-        self._first_sweep = Sweep()  # of the first scan, until the second is registered; then without points
-        self._first: Frame | None = None  # the same for the frame, if its points have times
         self._bridge: Bridge | None = None
         self._breaks: list[tuple[int, bool]] = []  # id of the first keyframe after each; whether loops may cross it
-        self._registration = self._tools.registration.fresh()
+        self._begin_map()
         self._keyframes.reset()
 
+    def _begin_map(self) -> None:
+        """Continue with an empty local map: the next scan is its first."""
+        self._registration, self._motion.settings = self._tools.registration.fresh(), self._settings
+        self._first_sweep = Sweep()  # of the first scan, until the second is registered; then without points
+        self._first: Frame | None = None  # the same for the frame, if its points have times
+
     def _use_tools(self, tools: Tools) -> None:
-        """Use these tools from now on; registration and motion follow in `reset` or `_switch_tools`."""
+        """Use these tools from now on; the registration and the motion follow in `_begin_map`."""
         self._tools, self._settings = tools, tools.settings
         self._keyframes.use(tools.keyframes)
 
     def _switch_tools(self, tools: Tools, frame: Frame) -> None:
         """Continue with other tools after a registered frame: same pose and motion, and a map of that scan only."""
         self._use_tools(tools)
-        self._motion.settings = self._settings
-        self._failures, self._first, self._first_sweep, self._bridge = 0, None, Sweep(), None
-        self._registration = tools.registration.fresh()
+        self._failures, self._bridge = 0, None
+        self._begin_map()
         scan = self._registration.prepare(self._sweep.centered(frame), self._motion.known_twist)
         self._registration.update(scan, self._motion.T)
 
@@ -209,8 +212,7 @@ class Odometry:
 
     def _discard_first(self, frame: Frame, dt: float) -> None:
         """The first scan shows only a part of the scene, as drivers start in mid-sweep: this frame is the first."""
-        self._first, self._first_sweep, self._motion.settings = None, Sweep(), self._settings
-        self._registration = self._tools.registration.fresh()
+        self._begin_map()
         self._keyframes.add_uncertainty(self._motion.unknown(dt))
         self._keyframes.request()
 
@@ -243,7 +245,7 @@ class Odometry:
             self._bridge = Bridge(self._registration, motion, self._clock.now - motion.seconds - dt)
         self._bridge.went_back |= self._clock.went_back
         self._clock.went_back = False
-        self._registration, self._first, self._first_sweep = self._registration.fresh(), None, Sweep()
+        self._begin_map()
         T_other = None if step is None else motion.T_registered @ step.T
         motion.begin(self._bridge.begin(self._clock.now, T_other, imu, reckoned, stepped))
         return motion.T
@@ -271,7 +273,7 @@ class Odometry:
         self._motion.add_ride_uncertainty()
         self._record_break(loops=False)
         self._keyframes.request()
-        self._registration = self._registration.fresh()
+        self._begin_map()
         self._registration.update(scan, self._motion.T)
         return registration.because(_CARRIED_REASON)
 
@@ -345,6 +347,4 @@ class Odometry:
         if self._motion.twist is None and self._bridge is None:
             return State.INITIALIZING
         uncertain = not registration.ok or registration.worst_sigma > self._settings.degraded_sigma
-        if uncertain or enclosed or self._breaks:
-            return State.DEGRADED
-        return State.TRACKING
+        return State.DEGRADED if uncertain or enclosed or self._breaks else State.TRACKING
