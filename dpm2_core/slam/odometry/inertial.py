@@ -7,9 +7,9 @@ is the difference to the scans over a second or more: at rest, where they show n
 larger covariance. A gyroscope whose rotations differ from those of the scans, as with a wrong orientation in
 /tf_static, is ignored until they agree for a while.
 
-Forces, averaged over a minute and corrected by the changes of velocity, show the up direction. It levels the odometry
-frame at a start at rest, and keeps it level: the correction is no faster than the odometry may drift. The error of the
-accelerations is also estimated from the difference to the scans.
+Forces, corrected by the changes of velocity, show the up direction. It levels the odometry frame at a start at rest,
+and keeps it level: the correction is no faster than the odometry may drift. The error of the accelerations is also
+estimated from the difference to the scans.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class InertialMotion:
         if before is None or self.turn is None or self._vertical.sigma > _MAX_ACCELERATION_SIGMA:
             return None
         times, forces = self._forces_since(before, now)
-        accelerations = self._vertical.accelerations(forces @ R.T) if len(times) else None
+        accelerations = self._vertical.accelerations(R, forces) if len(times) else None
         seconds = (now - before) * 1e-9
         rotation_covariance = self.covariance(seconds)
         if accelerations is None or rotation_covariance is None:
@@ -160,7 +160,10 @@ class InertialMotion:
             self._start_at_rest(T)
         if measured is None or before is None or twist is None:
             self._span = _Span(T[:3, :3])
-            self._vertical.pause()
+            if twist is None and before is not None:
+                self._vertical.break_off()
+            else:
+                self._vertical.pause()
             return
         seconds = (stamp - before) * 1e-9
         self._judge_rotation(measured[-1], T_before[:3, :3].T @ T[:3, :3], seconds)
@@ -172,7 +175,7 @@ class InertialMotion:
         if not len(forces) or not self._doubt.is_credible or by_imu:
             self._vertical.pause()
             return
-        self._vertical.add(T_before[:3, :3] @ forces.mean(0), T[:3, :3] @ twist[3:], seconds)
+        self._vertical.add(T_before[:3, :3], forces.mean(0), T[:3, :3] @ twist[3:], seconds)
         self._level_frame(T_before, T, seconds)
 
     def _start_at_rest(self, T: Array) -> None:
@@ -184,7 +187,7 @@ class InertialMotion:
         self._bias, self._bias_variance = s.rates.mean(0), _BIAS_AT_REST**2
         if s.up is None:
             return
-        if not self._vertical.start(T[:3, :3] @ s.forces.mean(0), T[:3, :3] @ s.up):
+        if not self._vertical.start(T[:3, :3], s.forces.mean(0), s.up):
             self.problem = "its acceleration at rest is not gravity: odom is not level"
             return
         R = self._vertical.turn

@@ -439,10 +439,11 @@ def test_one_that_is_left_out_does_not_tilt_the_frame() -> None:
 
 @pytest.mark.parametrize("unit", [1.0, 1 / GRAVITY], ids=["m/s2", "g"])
 def test_the_level_follows_a_drifting_odometry_without_a_jump(unit: float) -> None:
-    """The odometry tilts by 0.01 deg in each frame of 0.5 m, while the robot stays level."""
-    motion, drift = InertialMotion(), np.radians(0.01)
+    """The odometry tilts by 0.004 deg in each frame of 0.5 m, five times as fast as by the uncorrected angles of
+    KITTI's LiDAR, while the robot stays level."""
+    motion, drift = InertialMotion(), np.radians(0.004)
     frames = with_imu(
-        standing(np.eye(4), 500, ImuConfig(acceleration_bias=0.0, misaligned=0.0)),
+        standing(np.eye(4), 1000, ImuConfig(acceleration_bias=0.0, misaligned=0.0)),
         lambda rates, forces: (rates, unit * forces),
     )
     before, outs = np.eye(4), []
@@ -455,8 +456,8 @@ def test_the_level_follows_a_drifting_odometry_without_a_jump(unit: float) -> No
         outs.append(motion.T_level_odom @ T)
         before = T
     tilt = np.degrees(np.arccos(np.array(outs)[:, 2, 2]))
-    assert np.degrees(np.arccos(before[2, 2])) > 4.9
-    assert tilt[-1] < 3.5  # the mean of a minute lags
+    assert np.degrees(np.arccos(before[2, 2])) > 3.9
+    assert tilt[-1] < 2.0  # the filter lags, by 1.7 at most
     steps = se3.inverse(np.array(outs)[:-1]) @ np.array(outs)[1:]
     np.testing.assert_allclose(np.linalg.norm(steps[:, :3, 3], axis=1), 0.5, atol=1e-6)
     assert np.degrees(se3.angle(steps)).max() < 0.05
