@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Benefit of an IMU for a robot that rotates at 100 deg/s, and for a car whose LiDAR pauses: the same scans with an
-IMU, without, and with one that stops."""
+"""Benefit of an IMU for a robot that rotates at 100 deg/s, and for a car, also one whose LiDAR pauses: the same scans
+with an IMU, without, and with one that stops."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ WORLDS: dict[str, tuple[PresetName, int, float, float]] = {
     "building": ("indoor", 910, 1.2, 0.0),
     "car park": ("car_park", 911, 3.0, 90.0),
     "suburb": ("suburb", 912, 2.0, 90.0),
+    "streets": ("city", 914, 10.0, 0.0),
 }
 """Type of environment, seed, speed in m/s, and angle in degrees by which the robot also rotates to either side."""
 FRAMES = 200
@@ -119,7 +120,7 @@ def _table(worlds: dict[str, Any]) -> FigureTable:
     columns = {f"APE m, {variant}": f"{{{variant}[ape_rmse_m]:.3f}}" for variant in VARIANTS}
     columns |= {f"worst tilt deg, {variant}": f"{{{variant}[worst_tilt_deg]:.3f}}" for variant in VARIANTS}
     columns |= {"with / without": "{ratio:.2f}"}
-    return record_table(f"{LIDAR.beams} beams, rotations of 100 deg/s", ["world"], columns, worlds)
+    return record_table(f"{LIDAR.beams} beams, rotations of 100 deg/s; streets: a car", ["world"], columns, worlds)
 
 
 def _table_of_pauses(pauses: dict[str, Any]) -> FigureTable:
