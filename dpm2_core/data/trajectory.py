@@ -97,14 +97,13 @@ def read_trajectory(path: Path | str, allow_empty: bool = False) -> Trajectory:
         except ValueError as error:
             raise UsageError(f"{path}:{number}: {error}") from None
     numbers = np.array(rows)
-    if columns == _KITTI_360:  # the frame number and all 16 numbers of a 4 x 4 matrix
-        numbers, columns = numbers[:, :_KITTI_INDEXED], _KITTI_INDEXED
     poses, valid = _poses(numbers, columns)
     if not valid.all():
-        raise UsageError(f"{path}:{lines[int(np.argmin(valid))][0]}: not a finite rigid transform")
-    if columns == _KITTI_INDEXED and len(set(keys)) < len(keys):
+        hint = " (is it transposed?)" if columns == _KITTI_360 else ""
+        raise UsageError(f"{path}:{lines[int(np.argmin(valid))][0]}: not a finite rigid transform{hint}")
+    if columns in (_KITTI_INDEXED, _KITTI_360) and len(set(keys)) < len(keys):
         raise UsageError(f"{path}: the frame numbers of its first column repeat")
-    kind = {_TUM: "tum", _KITTI: "kitti", _KITTI_INDEXED: "kitti-indexed"}[columns]
+    kind = {_TUM: "tum", _KITTI: "kitti"}.get(columns, "kitti-indexed")
     return Trajectory(poses, np.array(keys, np.int64), kind)
 
 
@@ -125,6 +124,9 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
         valid = finite & (np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 0.01)
         quaternions = np.where(valid[:, None], quaternions, [0.0, 0.0, 0.0, 1.0])
         return se3.make(Rotation.from_quat(quaternions).as_matrix(), rows[:, 1:4]), valid
+    if columns == _KITTI_360:  # the frame number and all 16 numbers of a 4 x 4 matrix
+        finite &= np.abs(rows[:, 13:] - [0, 0, 0, 1]).max(1) < 0.01
+        rows = rows[:, :_KITTI_INDEXED]
     matrices = rows[:, -12:].reshape(-1, 3, 4)
     R = matrices[:, :, :3]
     # Published files have 5 to 7 digits; 0.01 separates rounding from a matrix that is no rotation.

@@ -82,6 +82,7 @@ def test_exponents_comments_and_blank_lines_are_read(tmp_path: Path) -> None:
         ("nan 1 2 3 0 0 0 1\n", ":1: nan is not a time stamp"),
         ("1e300 1 2 3 0 0 0 1\n", ":1: 1e300 is not a time stamp"),
         (f"0 {IDENTITY}\n1.5 {IDENTITY}\n", ":2: 1.5 is not a frame number"),
+        (f"0 {IDENTITY} 0 0 0 1\n1 1 0 0 0 0 1 0 0 0 0 1 0 5 6 7 1\n", ":2: not a finite .*transposed"),
         (f"7 {IDENTITY}\n7 {IDENTITY}\n", "frame numbers of its first column repeat"),
     ],
 )
