@@ -48,7 +48,7 @@ class StepSettings(Settings):
     final_rate: float = Field(1e-5, ge=0)
     """Learning rate at the end of the cosine."""
     warmup: int = Field(100, ge=0)
-    """Steps of linear warm-up."""
+    """Steps of linear warm-up, at most half of all."""
     decay: float = Field(1e-4, ge=0)
     """Weight decay."""
     clip: float = Field(1.0, gt=0)
@@ -106,11 +106,12 @@ def process_group() -> Iterator[tuple[int, int, torch.device]]:
 
 def learning_rate(settings: OptimizerSettings, step: int) -> float:
     """Linear warm-up, then a cosine from `rate` to `final_rate`, or drops."""
-    if step < settings.warmup:
-        return settings.rate * (step + 1) / settings.warmup
+    warmup = min(settings.warmup, settings.steps // 2)  # a short training must also reach its rate
+    if step < warmup:
+        return settings.rate * (step + 1) / warmup
     if settings.drop_every:
         return float(settings.rate * settings.drop ** (step // settings.drop_every))
-    done = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
+    done = (step - warmup) / max(1, settings.steps - warmup)
     return settings.final_rate + (settings.rate - settings.final_rate) * (1 + math.cos(math.pi * min(done, 1))) / 2
 
 

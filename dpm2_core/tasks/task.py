@@ -35,7 +35,7 @@ class TaskOptimizer(StepSettings):
     drop_every: int = Field(0, ge=0)
     """Epochs after which the rate is multiplied by `drop`, repeatedly, instead of the cosine; 0: the cosine."""
     warmup: int = Field(20, ge=0)
-    """Steps of linear warm-up."""
+    """Steps of linear warm-up, at most half of all."""
     ema: float = Field(0, ge=0, lt=1)
     """Decay of the averaged weights, which are the ones that are saved; 0: the last ones."""
 

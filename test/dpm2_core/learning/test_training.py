@@ -571,6 +571,12 @@ def test_learning_rate() -> None:
     assert [round(learning_rate(settings, s), 6) for s in (0, 9, 10, 60, 110)] == [0.1, 1.0, 1.0, 0.6, 0.2]
 
 
+def test_a_training_shorter_than_its_warm_up_reaches_its_rate() -> None:
+    """The warm-up is at most half of the steps: the default of 100 left a task of 8 steps below a tenth of its rate."""
+    settings = OptimizerSettings(steps=8, warmup=100, rate=1.0, final_rate=0.0)
+    assert [learning_rate(settings, s) for s in (0, 3, 4, 6)] == pytest.approx([0.25, 1.0, 1.0, 0.5])
+
+
 def test_tensorboard_has_the_figures_of_the_log(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """If its package is installed: the same losses at the same steps as in log.jsonl, to float32."""
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
