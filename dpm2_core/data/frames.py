@@ -140,8 +140,10 @@ class FrameBuilder:
         except MessageError as error:
             problem = self._report(topic, error)
             return Frame(stamp, NO_POINTS, index=index, up=self.up, problem=problem)
-        expected = self._settings.time_field is None and not topic.startswith("/kitti/") and len(points)
-        self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
+        unexpected = offset is None and self._settings.time_field is None and not topic.startswith("/kitti/")
+        # A single point, as of a part of a sweep that shows the sky, has no span: it says nothing about the times.
+        wrong = unexpected and np.count_nonzero(returned(points)) > 1
+        self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if wrong else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
         lidar_frame = cloud.header.frame_id
         second = messages.get(self._calibration.second_topic)

@@ -118,3 +118,14 @@ def test_a_cloud_without_times_says_so() -> None:
     assert smeared > 0.5
     assert problem == "no time field: not de-skewed"
     assert thickness(message, InputSettings(time_field=""))[1] == ""  # as requested
+
+
+def test_a_cloud_with_a_single_return_has_no_problem_of_its_times() -> None:
+    """Such as a part of a sweep that shows the sky: the log reported that all points have the same time."""
+    message = laid_out("Velodyne (velodyne_pointcloud)")
+    for width, problem in ((1, ""), (2, "all points have the same time: not de-skewed")):
+        message.width, message.row_step = width, width * message.point_step
+        message.data = message.data[: message.point_step] * width
+        builder = FrameBuilder(InputSettings(), Calibration("/points"), pytest.fail)
+        assert len(builder.frame(STAMP, message, 0).points) == width
+        assert builder.time_problem == problem
