@@ -25,6 +25,7 @@ _NEWEST_WEIGHT = 0.1  # weight of the newest span in the error of the accelerati
 
 _ANY, _ACCELEROMETER_SIGMA = 1e4, 0.2  # m/s2 of an unknown gravity, and of a bias with a mounting error of a degree
 _DRIFT = _GRAVITY * 5e-4  # m/s2 per root of a m or s: drives tilt by 1e-4 rad, or steadily in one direction
+_ACCELEROMETER_DRIFT = 1e-3  # m/s2 per root of a s: 0.06 in an hour, by temperature
 _BREAK = _GRAVITY * np.radians(3.0)  # m/s2: tilt of the odometry frame after an unknown motion
 _MAX_SIGMAS = 3.0  # of an error that counts in full
 _GRAVITY_PART, _DRIFT_PART, _ERROR_PART = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -104,6 +105,7 @@ class Vertical:
             return
         path = max(float(np.linalg.norm(velocity)), 1.0) * time
         self._covariance[_DRIFT_PART, _DRIFT_PART] += _DRIFT**2 * path * np.eye(3)
+        self._covariance[_ERROR_PART, _ERROR_PART] += _ACCELEROMETER_DRIFT**2 * time * np.eye(3)
         if self._unit:
             error = up - self._up(R_mean)
             self.sigma = _averaged(self.sigma, error)
